@@ -305,10 +305,11 @@ def test_the_share_of_right_answers_above_the_limit_of_doubt_is_that_of_the_tabl
     (row,) = re.findall(
         rf"^\| {DOUBT} to 0\.7 \|.*", text(DOCS.parent / "results/parts/reliability.md"), re.M
     )
-    _, _, _, real, _, _, simulated = row.strip("| ").split(" | ")
+    _, clouds, _, real, scans, _, simulated = row.strip("| ").split(" | ")
     page = " ".join(text(DOCS / "own-parts.md").split())
     assert f"*in doubt*: a confidence below {DOUBT}, or *lost*" in page
-    assert f"{real} % were right on real machine parts and {simulated} % on simulated ones" in page
+    shares = f"{real} % of {clouds} were right on real machine parts and {simulated} % of {scans}"
+    assert shares in page
 
 
 def test_the_readme_shows_the_median_of_the_demo():

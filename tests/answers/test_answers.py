@@ -299,6 +299,13 @@ def test_a_file_without_permission_stops_no_other(unprivileged):
     assert read_clouds(unprivileged, faults=faults)[0].ids == ("a.npy",)
     closed = f"{answers[2].file}: cannot be read: no permission"
     assert {str(fault) for fault in faults} == {answers[1].fault, closed}
+    (unprivileged / "closed").chmod(0o755)
+    (unprivileged / "closed" / "link").symlink_to(unprivileged / "a.npy")
+    (unprivileged / "closed").chmod(0o444)  # its names can be listed, and a link not be followed
+    faults.clear()
+    assert read_clouds(unprivileged, faults=faults)[0].ids == ("a.npy",)
+    assert any("closed/link: cannot be read: no permission" in str(fault) for fault in faults)
+    (unprivileged / "closed").chmod(0)
     (unprivileged / "a.npy").unlink()
     (unprivileged / "b.npy").unlink()
     with pytest.raises(InputError, match="closed: cannot be read: no permission"):

@@ -152,6 +152,8 @@ def test_rows_without_rounds_train_for_as_many_steps_as_those_with_them(small_sc
         workers=1,
     )
     assert command(options) == 0
+    assert "| without adaptation, 12 steps |" in (tmp_path / "uda.md").read_text()
+    assert command(replace(options, steps=(6,), methods=(), dry_run=True)) == 0
     setup = read_setup(tmp_path)
     assert setup.scale.more_steps == (18, 12)
     assert {"ordinary-12", "ordinary-18"} <= {row.key for row in Table("uda", setup).headings[0]}
@@ -180,6 +182,7 @@ def test_folders_of_a_scale_share_scans_and_resume(small_scales, tmp_path, monke
         )
         assert (six.steps["total"], twelve.steps["total"]) == (6, 12)
         assert six.source.checksum == twelve.source.checksum
+        assert (tmp_path / "again" / "smoke-12" / "data").resolve().name == "data-smoke"
     assert "1 runs, 0 of them missing" in capsys.readouterr().err
 
 

@@ -80,11 +80,13 @@ def _draw_meshes(step: "Step", cad: Path, sheet: Path) -> None:
 
 
 def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
-    from qs3.report.collect import collect
+    from qs3.files import write_json
+    from qs3.report.collect import collect, named_below
     from qs3.report.page import write_report
     from qs3.report.parts_page import write_parts_page
     from qs3.report.scans import draw_poses
     from qs3.workflow.adapt import describe
+    from qs3.workflow.labels import LEARNT
     from qs3.workflow.options import command
 
     csv, page, source = (out / name for name in (Written.ANSWERS, Written.PAGE, Written.SOURCE))
@@ -99,6 +101,10 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     parts = out / Written.PARTS_PAGE
     names = adapted.classifier.class_names
     write_parts_page(parts, answers, names, scans, adapted.labels)
+    if adapted.labels:
+        files = {answer.file.resolve(): named_below(answer.file, scans) for answer in answers}
+        learnt = {files[file]: name for file, name in adapted.labels.items() if file in files}
+        write_json(adapted.run / LEARNT, learnt)
     notify("")
     show(*columns(adapted.summary(), 1), csv, out / Written.POSES, page, parts, *pictures)
     notify(*describe(adapted, parts))

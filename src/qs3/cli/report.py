@@ -42,12 +42,12 @@ def report(
             has none: name the page.
     """
     from qs3.checks import check_numbers
-    from qs3.files import resolved
-    from qs3.report.collect import answer_scans, collect
+    from qs3.files import read_json, resolved
+    from qs3.report.collect import answer_scans, collect, named_below
     from qs3.report.page import check_page, write_report
     from qs3.report.parts_page import write_parts_page
     from qs3.runs.bundled import workplace
-    from qs3.runs.run import read_run
+    from qs3.workflow.labels import LEARNT
     from qs3.workflow.options import Written
 
     out = workplace(run) / Written.PAGE if out is None else out
@@ -70,7 +70,11 @@ def report(
     write_report(out, page)
     show(out)
     if any(answer.candidates is not None for answer in answers):
-        write_parts_page(parts, answers, page.class_names, scans, read_run(run).labelled)
+        kept = workplace(run) / LEARNT
+        learnt = read_json(kept) if kept.is_file() else {}
+        names = {answer.file.resolve(): named_below(answer.file, scans) for answer in answers}
+        labels = {file: learnt[name] for file, name in names.items() if name in learnt}
+        write_parts_page(parts, answers, page.class_names, scans, labels)
         show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")

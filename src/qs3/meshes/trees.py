@@ -177,15 +177,16 @@ def walk(
     above = (*above, os.path.realpath(folder))
     try:
         with os.scandir(folder) as listing:
-            entries = [entry for entry in listing if not entry.name.startswith(".")]
+            shown = [entry for entry in listing if not entry.name.startswith(".")]
+            entries = [(entry, entry.is_dir()) for entry in shown]  # of a link, it may be refused
     except OSError as error:
         if closed is None or not prefix:
             raise
         closed.append(error)
         return
-    for entry in entries:
+    for entry, is_folder in entries:
         path, ending = prefix + entry.name, os.path.splitext(entry.name)[1].lower()  # noqa: PTH122
-        if entry.is_dir():
+        if is_folder:
             if os.path.realpath(entry.path) not in above:
                 folders.append(path)
                 place = Path(entry.path)

@@ -109,7 +109,11 @@ class Cell:
         # The source of the supervised row has always been written S.
         source = "S" if self.row == SUPERVISED else self.source_name
         values = {"theta": self.threshold, "step": self.step, "steps": self.steps}
-        changed = [f"{name}-{value:g}" for name, value in values.items() if value is not None]
+        changed = [
+            f"{name}-{value if isinstance(value, int) else f'{value:g}'}"
+            for name, value in values.items()
+            if value is not None
+        ]
         label = "-".join([ROWS[self.row].method, *changed]) if changed else self.row
         task = f"{source}-{_name(self.target, self.target_sensor, self.target_clouds)}"
         return task, f"{label}@{self.network}" if self.network else label

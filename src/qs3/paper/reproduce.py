@@ -93,7 +93,7 @@ def reproduce(
     drawn = shown(setup) if galleries else []
     sides = choose_meshes(setup.scale, setup.shared)
     setup = replace(setup, meshes=describe_meshes(sides))
-    claim(setup, make=not dry_run)
+    setup = claim(setup, make=not dry_run)
     left = find_missing(cells, setup)  # a damaged record stops here, not after hours
     needed = data_sets_of(left, setup)
     plans = make_plans(setup.scale, sides, [*needed, *drawn])

@@ -36,21 +36,23 @@ class Setup:
     version: int = 1
 
 
-def claim(setup: Setup, *, make: bool = True) -> None:
+def claim(setup: Setup, *, make: bool = True) -> Setup:
     """Write the marker of a folder; an existing one may differ in columns and further rows alone.
 
-    Without ``make`` it is only checked.
+    Without ``make`` it is only checked. The setup that is returned has the further rows of both.
     """
     claim_folder(setup.out, MARKER, make=make)
+    kept = read_setup(setup.out) if (setup.out / MARKER).is_file() else setup
+    more = dict.fromkeys((*kept.scale.more_steps, *setup.scale.more_steps))
+    setup = replace(setup, scale=replace(setup.scale, more_steps=tuple(more)))
     wanted = _marker(setup)
     for data in wanted["data"].values():  # without the folders that the user's data lie in
         for part in filter(None, (data["train"], data["test"])):
             part["data"] = Path(part["data"]).name
     if (setup.out / MARKER).is_file():
-        held = _marker(read_setup(setup.out))
-        held["scale"]["sources"] = wanted["scale"]["sources"]  # usual columns: free to change
-        more = dict.fromkeys([*held["scale"]["more_steps"], *wanted["scale"]["more_steps"]])
-        held["scale"]["more_steps"] = wanted["scale"]["more_steps"] = [*more]  # so are further rows
+        held = _marker(kept)
+        for free in ("sources", "more_steps"):  # usual columns and further rows
+            held["scale"][free] = wanted["scale"][free]
         if difference := first_difference(held, wanted):
             name, theirs, ours = difference
             raise InputError(
@@ -58,6 +60,7 @@ def claim(setup: Setup, *, make: bool = True) -> None:
             )
     if make:
         write_json(setup.out / MARKER, wanted)
+    return setup
 
 
 def _marker(setup: Setup) -> dict[str, Any]:

@@ -158,7 +158,7 @@ def _command(table: Table, whole_paths: bool) -> str:
         "tasks": table.columns,
         "seeds": setup.seeds,
         "steps": [setup.scale.optimiser_steps, *setup.scale.more_steps]
-        * setup.scale.has_other_steps,
+        * (setup.scale.has_other_steps or bool(setup.scale.more_steps)),
         "threads": [setup.threads] * (setup.threads not in (None, 1)),
         "data": [_data_word(kind, domain, whole_paths) for kind, domain in setup.data.items()],
     }
@@ -212,10 +212,9 @@ def _intro(table: Table) -> list[str]:
             "flatters, and the paper's figures are of its own data: a yardstick, no target."
         )
     if scale.has_other_steps:
-        other = " Rows that name a number are trained for that many." * bool(scale.more_steps)
-        text.append(
-            f"Each network is trained for {steps:,} steps, not for the scale's own number.{other}"
-        )
+        text.append(f"Each network is trained for {steps:,} steps, not for the scale's own number.")
+    if any(cell.steps for cell in cells):
+        text.append("Rows that name a number of steps are trained for that many.")
     if scale.rounds and any(cell.warm_up for cell in cells):
         ours = ", ".join(f"{name} {value}" for name, value in scale.rounds.items())
         theirs = ", ".join(str(getattr(PRESETS["paper"], name)) for name in scale.rounds)

@@ -28,7 +28,7 @@ from qs3.runs.digests import fingerprint, shapes, whole_checksums
 from qs3.runs.history import EpochRecord, stopwatch
 from qs3.runs.loaded import Measured, facts_of
 from qs3.runs.rounds import ROUND, STATE, RoundRecord, record_round, select_round
-from qs3.runs.run import FEW_LABEL, FOREST, Run, RunSettings, claim_run, file_labels, write_run
+from qs3.runs.run import FEW_LABEL, FOREST, Run, RunSettings, claim_run, write_run
 from qs3.runs.settings import PRESETS, SelfTrainingSettings, TrainSettings, plan_rounds
 
 LABEL_WEIGHT = 10.0
@@ -148,7 +148,6 @@ class ForestPlan:
                 chosen={"stage": stage, "number": number},
                 threads=1,
                 preset=None if rounds is None else self.preset,
-                labelled=file_labels(labelled),
                 supervised=self.supervised,
                 folder=run_dir,
             )  # fmt: skip

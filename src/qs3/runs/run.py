@@ -9,7 +9,6 @@ from typing import Any
 
 from qs3.clouds.types import PointClouds, UnlabelledClouds
 from qs3.errors import InputError
-from qs3.escapes import utf8
 from qs3.evaluation.records import DataRecord, RunRecord
 from qs3.files import claim_folder, folder_lock, read_json, remove_left_overs, write_json
 from qs3.meshes.classes import check_class_names
@@ -66,8 +65,6 @@ class Run:
     chosen: Mapping[str, str | int] | None = None
     """Checkpoint that the rule chose: its ``stage`` and ``number``; None in earlier releases."""
     preset: str | None = None
-    labelled: Mapping[str, str] = field(default_factory=dict)
-    """`file_labels` of the labelled scans that a forest learnt from; none in earlier releases."""
     supervised: bool = False
     """True if its source, or its warm-up's, is the labelled training part of the target."""
     schema: int = SCHEMA_VERSION
@@ -321,14 +318,6 @@ def _require_same(folder: Path, begun: RunSettings, wanted: RunSettings) -> None
 def data_record(clouds: PointClouds | UnlabelledClouds) -> DataRecord:
     """Return the record of clouds."""
     return DataRecord.of(clouds.origin, clouds.checksum or fingerprint(clouds), len(clouds))
-
-
-def file_labels(labelled: PointClouds | None) -> dict[str, str]:
-    """Return the class of each cloud by its id, the resolved file, as UTF-8."""
-    if labelled is None:
-        return {}
-    names = (labelled.class_names[label] for label in labelled.labels)
-    return dict(zip(map(utf8, labelled.ids), names, strict=True))
 
 
 def sum_cost(epochs: Sequence[Any], rounds: Sequence[Any]) -> dict[str, Any]:

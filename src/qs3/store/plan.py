@@ -1,6 +1,7 @@
 """The work list of a data set: which scan of which mesh is in which row."""
 
 import collections
+import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
@@ -123,7 +124,7 @@ def resolve_renderer(settings: GenerateSettings) -> GenerateSettings:
     """Replace names of sensor and renderer by their settings, so that every worker has the same."""
     sensors = tuple(each.make_sensor() for each in settings.each_sensor())
     sensor = sensors if isinstance(settings.sensor, tuple) else sensors[0]
-    return settings.with_renderer(sensor=sensor)
+    return dataclasses.replace(settings.with_renderer(), sensor=sensor)
 
 
 def _checksum(items: Sequence[MeshItem]) -> str:

@@ -40,7 +40,6 @@ from qs3.runs.run import (
     RUN,
     SETTINGS,
     RunSettings,
-    file_labels,
     is_finished,
     refuse_other_run,
 )
@@ -52,7 +51,7 @@ from qs3.store.scan_item import RECIPES, SCAN_SECONDS, GenerateSettings, setting
 from qs3.structure import structure, unstructure
 from qs3.toml_files import read_toml
 from qs3.workflow.inputs import check_parts, read_inputs, refuse_written, unit_of
-from qs3.workflow.labels import read_labels
+from qs3.workflow.labels import LEARNT, read_labels
 from qs3.workflow.like import Measured, measure_clouds
 from qs3.workflow.like import like as resemble
 from qs3.workflow.options import AdaptOptions, Written, command, options, to_files
@@ -65,7 +64,7 @@ MARKER = "adapt.json"
 """Record of the first call, in the folder of its results."""
 _NAMED = {"sensor", "units", "seed", "like", "recipe", "meshes", "per_class", "classes"}
 """Settings that the printed command has besides, or that are labels for the record."""
-_OF_RUN = {SETTINGS, RUN, FOREST, LIBRARY, WITNESS, STATE}
+_OF_RUN = {SETTINGS, RUN, FOREST, LIBRARY, WITNESS, STATE, LEARNT}
 """Files of a run, which is replaced if its scans, labels or CAD are others."""
 _PAGES = {Written.PAGE, Written.PARTS_PAGE}
 """Pages of a run in its folder, unless they are the user's."""
@@ -98,8 +97,8 @@ class Adapted:
     scans: Scans
     source: PointClouds
     """The simulated scans, their clean twins and surfaces."""
-    labels: dict[str, str]
-    """`qs3.runs.run.file_labels` of the labelled scans."""
+    labels: dict[Path, str]
+    """Class of each labelled scan, by its resolved file."""
 
     def summary(self) -> list[tuple[str, ...]]:
         """Return rows of a table: class, scans, those in doubt, those of them that are lost."""
@@ -397,7 +396,10 @@ class _Way:
         answers = sorted([*answers, *found.faults], key=lambda answer: place[answer.file])
         write_text(csv, answers_csv(answers))
         write_text(poses, answers_json(answers))
-        labels = file_labels(self.labelled)
+        labels = {}
+        if (known := self.labelled) is not None:
+            classes = (known.class_names[label] for label in known.labels)
+            labels = dict(zip(map(Path, known.ids), classes, strict=True))
         adapted = Adapted(run, classifier, tuple(answers), found, self.clouds, labels)
         yield Step("predict", lines=tuple(lines), result=adapted)
 

@@ -15,6 +15,9 @@ from qs3.runs.digests import whole_checksums
 from qs3.workflow.options import to_files
 
 FILE, CLASS = "file", "class"
+LEARNT = "learnt.json"
+"""Class of each scan whose label ``qs3 adapt`` learnt, by its name on the page, in the folder of
+the run: the page that is made again shows it."""
 
 
 def read_labels(table: Path, class_names: Sequence[str], folder: Path | None = None) -> PointClouds:

@@ -98,7 +98,7 @@ def too_large(sides: Float[np.ndarray, "k"], items: Sequence[ListedCloud]) -> li
     sizes = ((item.path, reach(cleaned(item.points))) for item in items)
     return [
         Answer(path, fault=f"{path}: is {size:.3g} m large, and no part is over {high:.3g} m: " + (
-            f"is it {hint}" if (hint := unit_hint(size, (low, high)))
+            f"is it {hint}" if size > _ROOM and (hint := unit_hint(size, (low, high)))
             else "several parts, or the table? (--force answers it)"
         ))
         for path, size in sizes

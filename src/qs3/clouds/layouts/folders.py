@@ -64,8 +64,8 @@ def read_folder(
     ``qs3 segment`` makes it of a folder. Splits are called train, test or val, as `split_of` knows
     them. Hidden files and other endings are skipped, and the log counts other clouds. Clouds come
     in the order of their classes and names; classes are those of all splits, sorted. A file that
-    cannot be read raises InputError; or it adds to ``faults``, if given, and is left out. So does a
-    folder below the root.
+    cannot be read raises InputError, a folder below the root OSError; or they add to ``faults``, if
+    given, and are left out.
     """
     files = list_folder(root, endings, faults)
     names = sorted({file.class_name for file in files})

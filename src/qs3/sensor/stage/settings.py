@@ -294,9 +294,9 @@ class ScanSettings:
             chosen["variant"] = self.variant
         return MitsubaRenderer(**chosen, indirect=self.indirect)
 
-    def with_renderer(self: _Settings, **changes: Any) -> _Settings:
-        """Return the settings with the renderer itself in place of its name, and other changes."""
-        return dataclasses.replace(self, renderer=self.make_renderer(), **{**_OF_NAMED, **changes})
+    def with_renderer(self: _Settings) -> _Settings:
+        """Return the settings with the renderer itself in place of its name and its settings."""
+        return dataclasses.replace(self, renderer=self.make_renderer(), **_OF_NAMED)
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:

@@ -118,7 +118,7 @@ def stages(
     scene, base = settings.make_scene(), settings.make_sensor()
     base = base if rig is None else dataclasses.replace(base, rig=rig)
     # A sensor file is read only once, and a renderer that does not work fails before any work.
-    settings = settings.with_renderer(sensor=base)
+    settings = dataclasses.replace(settings.with_renderer(), sensor=base)
     object_class, other_class = (*class_names, "", "")[:2]
     sensor, drawn = draw(base, settings.ranges, rng.settings)
     mesh, scale, sizes = _sized(mesh, settings, object_class, sensor.object_size, rng)
