@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from qs3.cli import run
-from qs3.files import write_text
+from qs3.files import write_bytes, write_text
 from qs3.paper import TABLES
 from qs3.paper.domains import DATA
 from qs3.paper.setup import MARKER, read_setup
@@ -81,12 +81,14 @@ def main() -> None:
 def make(folder: str, options: argparse.Namespace) -> None:
     """Make a folder; those of a scale share their scans."""
     scale, place = folder.partition("-")[0], options.out / folder
-    if not (options.dry_run or place.exists()):
+    if not options.dry_run:
         scans = options.out / f"{DATA}-{scale}"
         scans.mkdir(parents=True, exist_ok=True)
-        place.mkdir()
-        (place / MARKER).write_bytes((RESULTS / folder / MARKER).read_bytes())
-        (place / DATA).symlink_to(Path("..", scans.name))
+        place.mkdir(exist_ok=True)
+        if not (place / MARKER).exists():
+            write_bytes(place / MARKER, (RESULTS / folder / MARKER).read_bytes())
+        if not (place / DATA).exists():
+            (place / DATA).symlink_to(Path("..", scans.name))
     for line in PLAN[folder]:
         words = ["reproduce", *line.split(), "--scale", scale, "--out", str(place)]
         words += ["--workers", options.workers, *["--dry-run"] * options.dry_run]

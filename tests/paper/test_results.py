@@ -17,6 +17,7 @@ from qs3.paper import TABLES
 from qs3.paper.cells import Cell
 from qs3.paper.figures import draw
 from qs3.paper.reproduce import choose_tables
+from qs3.paper.scales import SCALES
 from qs3.paper.setup import read_setup
 from qs3.paper.table import Table
 from qs3.paper.table_text import markdown
@@ -74,16 +75,19 @@ def test_one_command_makes_all_records_again(monkeypatch):
     again = importlib.import_module("again")
     assert again.PLAN.keys() == {folder.name for folder in FOLDERS}
     for folder, commands in again.PLAN.items():
-        planned = set()
+        planned, names = set(), set()
         for words in commands:
             options = tyro.cli(ReproduceOptions, args=[*words.split(), "--out", folder])
             setup = replace(read_setup(RESULTS / folder), seeds=options.seeds)
-            steps = setup.scale.optimiser_steps, *setup.scale.more_steps
-            assert options.steps == steps[: len(options.steps)]
+            usual = SCALES[setup.scale.name].optimiser_steps
+            assert (options.steps or (usual,))[0] == setup.scale.optimiser_steps
+            assert {*options.steps[1:]} <= {*setup.scale.more_steps}
+            names |= {*options.names}
             tables = choose_tables(options.names, setup, options.methods, options.tasks)
             cells = [cell for table in tables for cell in table.all_cells]
             planned |= {one.name for cell in cells for one in (cell, cell.warm_up) if one}
         assert {Cell(**one.experiment).name for one in records_in(folder)} <= planned, folder
+        assert {path.stem for path in (RESULTS / folder).glob("*.md")} == names
     assert (RESULTS / "hours.md").read_text("utf-8") == again.hours()
 
 
