@@ -51,8 +51,8 @@ PLAN: Mapping[str, tuple[str, ...]] = {
         "ordinary --steps 300 --methods pointnet dgcnn --tasks M-D S-D M-R S-R M-U S-U",
         "real2sim --steps 300 --methods pointnet",
         "uda --steps 300 1130 3900 --methods ordinary-1130 qbst-paper qbst-gentle --tasks M-D S-D",
-        "uda --steps 300 1130 3900 --methods ordinary-3900 spst defrec-1130 --tasks S-D",
-        "uda --steps 300 1130 3900 --seeds 0 --methods ordinary-3900 spst defrec-1130 --tasks M-D",
+        "uda --steps 300 1130 3900 --methods ordinary-3900 --tasks S-D",
+        "uda --steps 300 1130 3900 --seeds 0 1 --methods spst --tasks S-D",
     ),
     "full-2600": ("ordinary --seeds 0 --steps 2600 --methods dgcnn --tasks S-D S-F",),
 }
