@@ -104,14 +104,14 @@ def hours() -> str:
     """
     lines, total = ["| folder | table | trainings | hours of one core |", "|---" * 4 + "|"], 0.0
     for marker in sorted(RESULTS.glob(f"*/{MARKER}")):
-        folder, counted = marker.parent, set()
-        for name in (name for name in TABLES if (marker.parent / f"{name}.md").is_file()):
-            records = Table(name, read_setup(folder)).records.items()
+        folder, setup, counted = marker.parent, read_setup(marker.parent), set()
+        for name in (name for name in TABLES if (folder / f"{name}.md").is_file()):
+            records = Table(name, setup).records.items()
             spent = {cell.folder: one.cpu_seconds.get("total", 0.0) for cell, one in records}
             if new := spent.keys() - counted:
                 counted |= new
-                total += (hours := sum(spent[place] for place in new) / 3600)
-                lines.append(f"| {folder.name} | {name} | {len(new)} | {hours:.1f} |")
+                total += (here := sum(spent[place] for place in new) / 3600)
+                lines.append(f"| {folder.name} | {name} | {len(new)} | {here:.1f} |")
     return "\n".join([*lines, f"| all | | | {total:.1f} |", ""])
 
 

@@ -119,7 +119,7 @@ def test_chosen_classes_are_saved_as_labels(browser, tmp_path):
 
 def test_labels_that_were_learnt_are_chosen_and_saved_with_the_new_ones(browser, tmp_path):
     """Else a table from the page would replace those of the table before."""
-    labels = {Path("sure.ply").resolve(): "=nut"}
+    labels = {"sure.ply": "=nut"}
     write_parts_page(tmp_path / "page.html", ROWS, NAMES, labels=labels)
     browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.open((tmp_path / "page.html").as_uri())

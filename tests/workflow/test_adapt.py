@@ -140,7 +140,7 @@ def test_faults_come_before_a_scan(cad, scans, tmp_path):
         qs3.adapt(cad, [], out)
     with pytest.raises(InputError, match="absent: no such file"):
         qs3.adapt(cad, tmp_path / "absent", out)
-    with pytest.raises(InputError, match="give metres: divide millimetres by 1000"):
+    with pytest.raises(InputError, match="are they in millimetres"):
         qs3.adapt(cad, [1000 * points for points in scans], out)
     (tmp_path / "labels.csv").write_text("file,class\n000000.ply,blok\n", "utf-8")
     with pytest.raises(InputError, match="unknown class 'blok'"):

@@ -100,10 +100,13 @@ def _report(adapted: "Adapted", out: Path, options: AdaptOptions) -> None:
     write_report(page, collect(adapted.run, source=source_clouds, scans=answers, below=scans))
     parts = out / Written.PARTS_PAGE
     names = adapted.classifier.class_names
-    write_parts_page(parts, answers, names, scans, adapted.labels)
-    if adapted.labels:
-        files = {answer.file.resolve(): named_below(answer.file, scans) for answer in answers}
-        learnt = {files[file]: name for file, name in adapted.labels.items() if file in files}
+    learnt = {
+        named_below(answer.file, scans): adapted.labels[file]
+        for answer in answers
+        if (file := answer.file.resolve()) in adapted.labels
+    }
+    write_parts_page(parts, answers, names, scans, learnt)
+    if learnt:
         write_json(adapted.run / LEARNT, learnt)
     notify("")
     show(*columns(adapted.summary(), 1), csv, out / Written.POSES, page, parts, *pictures)

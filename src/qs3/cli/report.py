@@ -43,7 +43,7 @@ def report(
     """
     from qs3.checks import check_numbers
     from qs3.files import read_json, resolved
-    from qs3.report.collect import answer_scans, collect, named_below
+    from qs3.report.collect import answer_scans, collect
     from qs3.report.page import check_page, write_report
     from qs3.report.parts_page import write_parts_page
     from qs3.runs.bundled import workplace
@@ -72,9 +72,7 @@ def report(
     if any(answer.candidates is not None for answer in answers):
         kept = workplace(run) / LEARNT
         learnt = read_json(kept) if kept.is_file() else {}
-        names = {answer.file.resolve(): named_below(answer.file, scans) for answer in answers}
-        labels = {file: learnt[name] for file, name in names.items() if name in learnt}
-        write_parts_page(parts, answers, page.class_names, scans, labels)
+        write_parts_page(parts, answers, page.class_names, scans, learnt)
         show(parts)
     notify(f"{out.stat().st_size / 1e6:.1f} MB, one file. Open it in a browser.")
     raise_last(page.faults, page.total, "clouds")

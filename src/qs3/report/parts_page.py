@@ -25,7 +25,7 @@ def write_parts_page(
     answers: "Sequence[Answer]",
     class_names: Sequence[str],
     below: Path | None = None,
-    labels: Mapping[Path, str] | None = None,
+    labels: Mapping[str, str] | None = None,
 ) -> None:
     """Write `parts_page` to ``path``, whole or not at all; equal answers give equal bytes."""
     write_text(Path(path), parts_page(answers, class_names, below, labels))
@@ -35,18 +35,17 @@ def parts_page(
     answers: "Sequence[Answer]",
     class_names: Sequence[str],
     below: Path | None = None,
-    labels: Mapping[Path, str] | None = None,
+    labels: Mapping[str, str] | None = None,
 ) -> str:
     """Return the page as text: answers sorted by doubt, counts by class, and a form for labels.
 
-    A reader may choose one of ``class_names`` as the label of a scan; those of ``labels``, by
-    resolved file, are chosen. Files are named as seen from the folder ``below``, as labels of a
-    training are found.
+    A reader may choose one of ``class_names`` as the label of a scan; those of ``labels`` are
+    chosen. Files are named as seen from the folder ``below``, as labels of a training are found.
     """
     ordered = sorted(answers, key=lambda answer: answer.order)
     rows = [_row(answer, named_below(answer.file, below)) for answer in ordered]
-    for row, answer in zip(rows, ordered, strict=True):
-        row["label"] = (labels or {}).get(answer.file.resolve())
+    for row in rows:
+        row["label"] = (labels or {}).get(row["file"])
     counts = Counter(row["name"] for row in rows)
     return environment().from_string(asset("parts.html.jinja")).render(
         class_names=class_names,

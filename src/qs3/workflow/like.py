@@ -103,7 +103,7 @@ def measure_clouds(
     size = _range([float(np.ptp(cloud, axis=0).max()) for cloud in clouds])
     if size[0] > 10:
         raise InputError(
-            f"{scans[0]}: clouds {size[0]:.3g} m large; give metres: divide millimetres by 1000"
+            f"{scans[0]}: clouds {size[0]:.3g} m large: are they in millimetres? Divide by 1000"
         )
     distance = elevation = apart = cut = None
     if places := _places(scans, names):

@@ -48,8 +48,6 @@ def experiment(scale: Scale) -> Experiment:
                     fields = {"row": row, "network": network, "steps": steps}
                     title = f"{_TITLES[row]}{words}{of}"
                     rows.append(Heading(f"{_key(row, steps)}{after}", title, fields))
-        for steps in numbers:
-            words = f", {steps:,} steps" if steps else ""
             for what, first, second in _compared(steps):
                 if {first, second} <= {*methods}:
                     keys = (f"{_key(row, steps)}{after}" for row in (first, second))

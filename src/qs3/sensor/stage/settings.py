@@ -25,10 +25,10 @@ Range: TypeAlias = tuple[float, float]
 """Low and high; LOW:HIGH on the command line."""
 
 _RENDERERS = ("mitsuba", "cycles")
-_OF_CAMERA = ("sensor", "renderer", "samples", "indirect", "variant")
+_OF_NAMED = ("samples", "indirect", "variant")
+"""Settings of a renderer that is named."""
+_OF_CAMERA = ("sensor", "renderer", *_OF_NAMED)
 """Settings that the descriptions of sensor and renderer have."""
-_OF_NAMED: dict[str, Any] = {"samples": None, "indirect": "cached", "variant": "auto"}
-"""Settings of a renderer that is named, and their defaults."""
 _BY_SENSOR = "by sensor"
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {
@@ -270,7 +270,7 @@ class ScanSettings:
 
     def make_renderer(self) -> Renderer:
         """Return the renderer; InputError if settings of a named one stand beside an object."""
-        others = [name for name, usual in _OF_NAMED.items() if getattr(self, name) != usual]
+        others = [n for n in _OF_NAMED if getattr(self, n) != getattr(ScanSettings, n)]
         if not isinstance(self.renderer, str):
             if others:
                 raise InputError(
@@ -296,7 +296,8 @@ class ScanSettings:
 
     def with_renderer(self: _Settings) -> _Settings:
         """Return the settings with the renderer itself in place of its name and its settings."""
-        return dataclasses.replace(self, renderer=self.make_renderer(), **_OF_NAMED)
+        usual = {name: getattr(ScanSettings, name) for name in _OF_NAMED}
+        return dataclasses.replace(self, renderer=self.make_renderer(), **usual)
 
     @property
     def real_size(self) -> Literal["file", "class"] | None:
